@@ -145,12 +145,12 @@ def main(arguments: Sequence[str]) -> int:
 def _measure_all(given: argparse.Namespace) -> None:
     names = ("tasks", "episodes", "demonstrations", "steps")
     settings = {name: getattr(given, name) for name in names}
-    rows = []
+    rows, seeds = [], set(given.seeds)
     if given.out.exists():
         try:
             found = json.loads(given.out.read_text("utf-8-sig"))
             rows = found.pop("rows")
-            del found["seeds"]
+            seeds |= set(found.pop("seeds"))
             there = {(row["seed"], row["task"]) for row in rows}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{given.out} cannot be read ({error}); name another --out") from None
@@ -164,7 +164,7 @@ def _measure_all(given: argparse.Namespace) -> None:
             if (seed, task) in there:
                 continue
             rows.append(measure(seed, task, other, given))
-            text = json.dumps({**settings, "seeds": given.seeds, "rows": rows}, indent=1)
+            text = json.dumps({**settings, "seeds": sorted(seeds), "rows": rows}, indent=1)
             write_atomically(given.out, f"{text}\n".encode())
             print(f"seed {seed}, {task}: measured", flush=True)
 

@@ -23,6 +23,7 @@ from mani_skill.utils.structs import Link, Pose
 from sapien.physx import PhysxCollisionShapeConvexMesh
 from sapien.render import RenderBodyComponent, RenderMaterial, RenderShapeTriangleMesh
 
+from symsteer.bench.sim.patches import is_batched
 from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.move_cube import PushCube
@@ -66,8 +67,8 @@ class Seen(SymmetricTask):
 
     needs_cameras: ClassVar[bool] = True
     _last_cloud: torch.Tensor | None = None
-    _in_pictures: dict[RenderBodyComponent, bool]
-    """Whether a part is drawn for the cameras (or for films, which need it to look right)."""
+    _for_cameras: dict[RenderBodyComponent, bool]
+    """Of parts that only the cameras or only films draw: whether the cameras do."""
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -92,10 +93,13 @@ class Seen(SymmetricTask):
         super()._load_scene(options)
         # No cloud has points of table, ground and robot, and drawing them would take most of the
         # time. The robot hides what is behind it: its hulls do so, which have few triangles.
-        self._in_pictures = {}
+        self._for_cameras = {}
+        if not is_batched(self.scene):
+            # On a GPU ManiSkill moves one drawn part of each body, and cannot hide it later.
+            return
         for furniture in (self.table_scene.table, self.table_scene.ground):
             for entity in furniture._objs:
-                self._in_pictures[entity.find_component_by_type(RenderBodyComponent)] = False
+                self._for_cameras[entity.find_component_by_type(RenderBodyComponent)] = False
         for link in self.agent.robot.links:
             for body in link._objs:
                 mesh = body.entity.find_component_by_type(RenderBodyComponent)
@@ -103,14 +107,14 @@ class Seen(SymmetricTask):
                 # The boxes of fingers would hide more.
                 convex = {isinstance(shape, PhysxCollisionShapeConvexMesh) for shape in shapes}
                 if mesh and convex == {True}:
-                    hulls = drawn(shapes)
+                    hulls = hulls_of(shapes)
                     body.entity.add_component(hulls)
-                    self._in_pictures |= {mesh: False, hulls: True}
-        self._draw(for_pictures=False)
+                    self._for_cameras |= {mesh: False, hulls: True}
+        self._draw(for_cameras=False)
 
-    def _draw(self, for_pictures: bool) -> None:
-        for component, in_pictures in self._in_pictures.items():
-            component.visibility = float(in_pictures == for_pictures)
+    def _draw(self, for_cameras: bool) -> None:
+        for component, of_cameras in self._for_cameras.items():
+            component.visibility = float(of_cameras == for_cameras)
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         true = self.manipulated.pose
@@ -153,10 +157,10 @@ class Seen(SymmetricTask):
         marks = [body for body in self._hidden_objects if not body.hidden]
         for body in marks:
             body.hide_visual()
-        self._draw(for_pictures=True)
+        self._draw(for_cameras=True)
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         self.capture_sensor_data()
-        self._draw(for_pictures=False)
+        self._draw(for_cameras=False)
         for body in marks:
             body.show_visual()
         points, labels = [], []
@@ -169,7 +173,7 @@ class Seen(SymmetricTask):
         return torch.cat(points, dim=1), torch.cat(labels, dim=1)
 
 
-def drawn(shapes: Sequence[PhysxCollisionShapeConvexMesh]) -> RenderBodyComponent:
+def hulls_of(shapes: Sequence[PhysxCollisionShapeConvexMesh]) -> RenderBodyComponent:
     """What is drawn where convex collision shapes are."""
     component = RenderBodyComponent()
     for shape in shapes:

@@ -139,39 +139,44 @@ def camera_errors(summary: Summary) -> list[CameraError]:
     used = {place: tables for place, tables in places.items() if len(tables) == most}
     shared = [*map(set, used.values())]
     distances = set.union(set(), *shared) if most < 2 else set.intersection(*shared)
-    changes = {
-        distance: [
-            (unbroken[p], tables[distance]) for p, tables in used.items() if distance in tables
-        ]
-        for distance in sorted(distances)
+    known = [a for a, role in summary.roles.items() if a == BASE or role == "learner"]
+    # All rows are of the same base policies.
+    policies = {
+        (place, agent): _shared(
+            [unbroken[place], *(tables[each] for each in distances & tables.keys())], agent
+        )
+        for place, tables in used.items()
+        for agent in known
     }
-    agents = [
-        agent
-        for agent, role in summary.roles.items()
-        if (agent == BASE or role == "learner")
-        and all(
-            len(_changes(*worlds, agent)) >= MIN_SEEDS for of in changes.values() for worlds in of
-        )
-    ]
-    return [
-        CameraError(
-            distance,
-            len(cells),
-            {agent: success_in([far for _, far in cells], agent) for agent in agents},
-            {
-                agent: stratified_bootstrap([_changes(*worlds, agent) for worlds in cells])
-                for agent in agents
-            },
-        )
-        for distance, cells in (changes.items() if STANDARD in agents else ())
-    ]
+    agents = [a for a in known if all(len(policies[p, a]) >= MIN_SEEDS for p in used)]
+    errors = []
+    for distance in sorted(distances) if STANDARD in agents else ():
+        cells = [(unbroken[p], used[p][distance], p) for p in used if distance in used[p]]
+        success, change = {}, {}
+        for a in agents:
+            success[a] = fmean(fmean(_of(far, a)[q] for q in policies[p, a]) for _, far, p in cells)
+            change[a] = stratified_bootstrap(
+                [_changes(near, far, a, policies[p, a]) for near, far, p in cells]
+            )
+        errors.append(CameraError(distance, len(cells), success, change))
+    return errors
 
 
-def _changes(before: Table, after: Table, agent: str) -> list[Sample]:
-    """Of final success, on each base policy that an agent has in both cells."""
-    rows = before.row_of(agent), after.row_of(agent)
-    first, second = (row.by_policy("success") if row else {} for row in rows)
-    return [Sample.constant(second[p] - first[p], p) for p in sorted(first.keys() & second.keys())]
+def _changes(near: Table, far: Table, agent: str, policies: Sequence[str]) -> list[Sample]:
+    """Of final success, on each of these base policies."""
+    before, after = _of(near, agent), _of(far, agent)
+    return [Sample.constant(after[policy] - before[policy], policy) for policy in policies]
+
+
+def _of(table: Table, agent: str) -> dict[str, float]:
+    """Final success of an agent by base policy."""
+    row = table.row_of(agent)
+    return row.by_policy("success") if row else {}
+
+
+def _shared(tables: Sequence[Table], agent: str) -> list[str]:
+    """The base policies on which an agent has runs in all these cells."""
+    return sorted(set.intersection(*(set(_of(table, agent)) for table in tables)))
 
 
 def _place(key: Key) -> tuple[str, ...]:

@@ -215,6 +215,10 @@ def test_what_cannot_be_followed_is_refused(sentence, problem):
     assert "say it as in 'Push the cube into the target.'" in str(refused.value)
 
 
+def test_another_form_of_a_known_word_is_enough():
+    assert small_options("edp-told", instruction="Pushing.").instruction == "Pushing."
+
+
 def test_clouds_of_points_are_refused():
     cloud = Layout(
         [*OBS.fields, Field("cloud_xy", 1, multiplicity=5), Field("cloud_z", 0, multiplicity=5)]

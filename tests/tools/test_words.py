@@ -14,7 +14,7 @@ from symsteer.leaderboard.records import write_record
 from symsteer.leaderboard.runs import load_runs
 from symsteer.leaderboard.text import MINUS, SPACE
 from symsteer.policies.words import _data, wordings
-from tests.leaderboard.record_factory import edited, make_cell
+from tests.leaderboard.record_factory import edited, make_cell, make_record
 from tools import words
 from tools.pages import words as page
 
@@ -95,6 +95,8 @@ def test_it_goes_on_with_what_is_missing(tmp_path, monkeypatch, capsys):
     assert words.main([*again, "--episodes", "12"]) == 0
     assert measured == [(1, pull, push), (2, push, pull), (2, pull, push)]
     assert json.loads(path.read_text())["rows"][0] == ROWS[0]
+    assert words.main([*again[:-2], "3", "--episodes", "12"]) == 0
+    assert json.loads(path.read_text())["seeds"] == [1, 2, 3]
     before = path.read_bytes()
     other_tasks = [*again, "--episodes", "12", "--tasks", push, pull, "PickCube-v1"]
     for other in ([*again, "--episodes", "6"], other_tasks):
@@ -124,30 +126,41 @@ def test_tables(tmp_path):
     assert another[1].startswith(f"{MINUS}0.33 [{MINUS}0.64, {MINUS}0.01]")
 
 
-def records(folder, told):
-    """Five runs of two agents of each kind on two tasks; `base` solves .5 of all of them."""
-    for name, rate in (("edp-joint", 0.25), ("edp-told", told)):
-        for task in ("PickCube-v1", "PlaceSphere-v1"):
-            for record in make_cell({"base": 0.5, "standard": rate}, task=task):
-                made = edited(record, {"base_policy/name": name})
-                write_record(made, folder / f"{name}-{task}-{record.run_id}.json")
+def records(folder):
+    """Two seeds of two agents of each kind on two tasks, each with a success of its own."""
+    for k, name in enumerate(("edp-joint", "edp-told")):
+        for task, begin in (("PickCube-v1", 0.1), ("PlaceSphere-v1", 0.5)):
+            for seed in range(2):
+                for agent, more in (("base", 0.0), ("standard", 0.2)):
+                    # 4 in 40 at most differ between the kinds, by seed.
+                    rate = begin + more + k * (0.05 + 0.05 * seed) * (agent == "standard")
+                    (made,) = make_cell({agent: [0.0, rate]}, seeds=1, task=task)
+                    config = {"agent": agent, "seed": seed, "task": task}
+                    record = make_record(made.evaluations, **config)
+                    path = folder / f"{name}-{task}-{agent}-{seed}.json"
+                    write_record(edited(record, {"base_policy/name": name}), path)
     return load_runs([folder])
 
 
 def test_steered(tmp_path):
-    runs = records(tmp_path, 0.75)
+    runs = records(tmp_path)
     reached, gaps = page.steered(runs).replace(SPACE, " ").split("\n\n")
     rows = [line.strip("| ").split(" | ") for line in reached.splitlines()[2:]]
-    joint, told = (
-        ["0.50 [0.50, 0.50]", "0.25 [0.25, 0.25]"],
-        ["0.50 [0.50, 0.50]", "0.75 [0.75, 0.75]"],
-    )
-    assert [row[2:] for row in rows] == [joint, told, joint, told]
+    assert [row[0] for row in rows] == ["PickCube-v1"] * 2 + ["PlaceSphere-v1"] * 2
+    assert [row[2:] for row in rows] == [
+        ["0.10 [0.10, 0.10]", "0.30 [0.30, 0.30]"],
+        ["0.10 [0.10, 0.10]", "0.38 [0.35, 0.40]"],
+        ["0.50 [0.50, 0.50]", "0.70 [0.70, 0.70]"],
+        ["0.50 [0.50, 0.50]", "0.78 [0.75, 0.80]"],
+    ]
     base, standard = gaps.splitlines()[2:]
     assert "`base` | 0.00 [0.00, 0.00]" in base
-    assert "`standard` | +0.50 [+0.50, +0.50]" in standard
-    with pytest.raises(UserError, match="are not all there"):
-        page.steered(runs[1:])
+    # By seed .05 and .1; t with one degree of freedom is 12.7 and 6.3.
+    assert f"`standard` | +0.08 [{MINUS}0.24, +0.39]" in standard
+    assert f"+0.08 [{MINUS}0.08, +0.23]" in standard
+    for wrong in (runs[1:], [*runs, runs[0]], []):
+        with pytest.raises(UserError, match="are not all there"):
+            page.steered(wrong)
 
 
 @pytest.mark.parametrize("rows", [ROWS[:3], ROWS[:2]], ids=["a task", "a training"])

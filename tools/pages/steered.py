@@ -39,18 +39,23 @@ def steering(runs: Sequence[Run]) -> str:
     """Two tables: success of each agent in the last fifth of the steps, and differences of pairs.
 
     Raises:
-        UserError: if the runs are of several kinds, or some are not finished.
+        UserError: if the runs are of several kinds, or one is missing.
     """
     summary = summarize(runs)
-    if len(summary.tables) != 1 or summary.set_aside or not all(run.finished for run in runs):
-        raise UserError(
-            "runs of one task and world are needed, each once, and all of them finished"
-        )
+    if len(summary.tables) != 1 or summary.set_aside:
+        raise UserError("runs of one task and world are needed, each of them once")
     (table,) = summary.tables
-    reached = []
-    for row in table.rows:
-        values = list(row.by_policy("success").values())
-        reached.append([code(row.agent), spread(values), str(len(values))])
+    agents = [BASE, ZERO, *LEARNERS]
+    rows = {row.agent: row.by_policy("success") for row in table.rows}
+    policies = set().union(*rows.values())
+    if len(policies) < 2 or any(rows.get(agent, {}).keys() != policies for agent in agents):
+        raise UserError(
+            f"finished runs of {', '.join(agents)} are needed, on the same base policies, two or "
+            "more; go on with the sweep"
+        )
+    reached = [
+        [code(agent), spread(list(rows[agent].values())), str(len(policies))] for agent in agents
+    ]
     gaps = []
     for first, second in PAIRS:
         pairs = advantage(table, first, second, "success")

@@ -7,6 +7,7 @@ python -m tools.pages.words FOLDER    # from words.json, which `python -m tools.
 
 from __future__ import annotations
 
+import itertools
 import json
 import statistics
 import sys
@@ -34,6 +35,8 @@ SHOWN = {
     "of these, with a new verb": "new_verb",
     "words of another task": "another_task",
 }
+
+KINDS = ("edp-joint", "edp-told")
 
 INTERVALS = ("success, 95 % interval", "90 % interval")
 
@@ -91,36 +94,37 @@ def differences(rows: Sequence[Row]) -> str:
 
 
 def steered(runs: Sequence[Run]) -> str:
-    """Two tables: success of the final evaluation by agent, and by how much that of `edp-told` is
-    higher.
+    """Two tables: success of the final evaluation by agent, and how much higher `edp-told` is.
 
     Raises:
         UserError: an agent lacks a run that others have, or a run is not finished.
     """
-    reached: dict[tuple[str, str, str], dict[int, float]] = {}
-    for run in runs:
-        settings = run.record.settings
-        place = (settings.task, run.record.base_policy.name, run.agent)
-        solved = run.final_success.values()
-        reached.setdefault(place, {})[run.seed] = statistics.mean(solved) if solved else -1
-    tasks, kinds = (sorted({place[k] for place in reached}) for k in range(2))
+    finished = [run for run in runs if run.finished]
+    reached = {
+        (run.record.settings.task, run.record.base_policy.name, run.agent, run.seed): (
+            statistics.mean(run.final_success.values())
+        )
+        for run in finished
+    }
+    tasks = sorted({run.record.settings.task for run in runs})
     roles = {run.agent: run.record.role for run in runs}
     agents = sorted(roles, key=lambda agent: row_place(agent, roles[agent]))
     seeds = sorted({run.seed for run in runs})
-    whole = len(tasks) * len(kinds) * len(agents) * len(seeds)
-    every = [value for of_seed in reached.values() for value in of_seed.values()]
-    if len(every) != whole or len(runs) != whole or min(every) < 0:
-        raise UserError("the runs of the suite words are not all there; go on with the sweep")
+    planned = itertools.product(tasks, KINDS, agents, seeds)
+    if not reached or set(planned) != reached.keys() or len(runs) != len(reached):
+        raise UserError(
+            "the runs of the suite words are not all there, each of them once; go on with the sweep"
+        )
     lines = [
-        [task, code(kind), *(spread(list(reached[task, kind, a].values())) for a in agents)]
+        [task, code(kind), *(spread([reached[task, kind, a, s] for s in seeds]) for a in agents)]
         for task in tasks
-        for kind in kinds
+        for kind in KINDS
     ]
     gaps = []
     for agent in agents:
-        told, one_hot = (
-            [statistics.mean(reached[task, kind, agent][seed] for task in tasks) for seed in seeds]
-            for kind in ("edp-told", "edp-joint")
+        one_hot, told = (
+            [statistics.mean(reached[task, kind, agent, seed] for task in tasks) for seed in seeds]
+            for kind in KINDS
         )
         gap = [a - b for a, b in zip(told, one_hot, strict=True)]
         gaps.append([code(agent), interval(gap), interval(gap, 0.9)])
@@ -144,22 +148,22 @@ def render(folder: Path) -> str:
     path = folder / "words.json"
     try:
         rows = read(path)
-        trainings = len({row["seed"] for row in rows})
-        runs = load_runs([folder / "records"])
-        policies = len({run.seed for run in runs})
-        return "\n\n".join(
-            (
-                f"**Without steering**, {trainings} trainings of each: mean [lowest, highest].",
-                successes(rows),
-                differences(rows),
-                f"**Steered**, {policies} policies of each: mean [lowest, highest].",
-                steered(runs),
-            )
-        )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{path} cannot be read ({error}); write it again with `python -m tools.words`"
         ) from None
+    trainings = len({row["seed"] for row in rows})
+    runs = load_runs([folder / "records"])
+    policies = len({run.seed for run in runs})
+    return "\n\n".join(
+        (
+            f"**Without steering**, {trainings} trainings of each: mean [lowest, highest].",
+            successes(rows),
+            differences(rows),
+            f"**Steered**, {policies} policies of each: mean [lowest, highest].",
+            steered(runs),
+        )
+    )
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -160,6 +160,8 @@ def picture_of(tasks: Sequence[str]) -> np.ndarray:
     """What the command line asks for, uint8."""
     if not tasks:
         return contact_sheet()
+    if unseen := [task for task in tasks if len(tasks) > 1 and not task_class(task).is_seen()]:
+        raise UserError(f"no camera sees {unseen[0]}: name one task, or tasks that cameras see")
     if len(tasks) > 1:
         return np.concatenate([worlds_picture(task, "actuator_offset:0.5") for task in tasks])
     (task,) = tasks

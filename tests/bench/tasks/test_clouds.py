@@ -2,15 +2,20 @@
 
 import math
 
+import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.utils.structs import Link
+from sapien import physx
+from sapien.physx import PhysxCollisionShapeConvexMesh
+from sapien.render import RenderBodyComponent, RenderShapeTriangleMesh
 
 from symsteer.bench.audit.result import AuditSettings
 from symsteer.bench.demos import collect, load
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import EMBODIMENTS, make, task_class
-from symsteer.bench.tasks.clouds import POINTS, moved, thinned
+from symsteer.bench.tasks.clouds import POINTS, hulls_of, moved, thinned
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
@@ -146,17 +151,46 @@ def test_the_robot_hides_what_its_meshes_would_hide_and_films_show_them(embodime
     for number, body in env.segmentation_id_map.items():
         if isinstance(body, Link) or body is env.manipulated:
             ids["robot" if isinstance(body, Link) else "cube"].append(number)
+    drawn, capture = [], env.capture_sensor_data
+    env.capture_sensor_data = lambda: [drawn.append(triangles(env)), capture()]
     pixels = []
     for _ in range(2):
         label = env.look()[1]
         pixels.append([int(torch.isin(label, torch.tensor(each)).sum()) for each in ids.values()])
-        assert all(part.visibility != seen for part, seen in env._in_pictures.items())
-        # The second time all is drawn as in films.
-        env._draw = lambda for_pictures: None
+        # Afterwards all is as in films.
+        assert triangles(env) > 25_000
+        env._draw = lambda for_cameras: None
     env.close()
+    assert drawn[0] < 5_000
+    assert drawn[1] > 25_000
     (cube, robot), (true_cube, true_robot) = pixels
     assert 0.97 * true_cube < cube < 1.01 * true_cube
     assert 0.97 * true_robot < robot < 1.15 * true_robot
+
+
+def triangles(env):
+    """Those that are drawn in the first scene, table and ground included."""
+    components = [
+        component
+        for entity in env.scene.sub_scenes[0].entities
+        for component in entity.components
+        if isinstance(component, RenderBodyComponent) and component.visibility
+    ]
+    meshes = [
+        s for c in components for s in c.render_shapes if isinstance(s, RenderShapeTriangleMesh)
+    ]
+    return sum(len(part.triangles) for mesh in meshes for part in mesh.parts)
+
+
+@needs_vulkan
+@pytest.mark.slow
+def test_hulls_are_where_the_shapes_are():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    shape = PhysxCollisionShapeConvexMesh(corners, [2, 1, 3], physx.get_default_material())
+    shape.local_pose = sapien.Pose([1, 2, 3])
+    (surface,) = hulls_of([shape]).render_shapes
+    assert surface.local_pose.p.tolist() == [1, 2, 3]
+    assert surface.parts[0].vertices.max(axis=0).tolist() == [2, 1, 3]
 
 
 @needs_vulkan

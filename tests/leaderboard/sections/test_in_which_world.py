@@ -3,7 +3,12 @@
 import pytest
 
 from symsteer.leaderboard.sections import in_which_world
-from tests.leaderboard.record_factory import make_cell, view_of
+from tests.leaderboard.record_factory import (
+    make_cell,
+    make_record,
+    view_of,
+    with_policies,
+)
 
 
 def view(*cells):
@@ -108,6 +113,19 @@ def test_what_a_camera_error_costs():
     assert far.change["equivariant"].value == pytest.approx(0.0)
     assert [row[0] for row in rows(seen, 3)] == ["1 cm", "2 cm"]
     assert rows(seen, 3)[1][1].startswith("0.60<br>\u22120.20 [")
+
+
+def test_camera_errors_are_of_the_same_base_policies():
+    """A sixth policy was not run at 1 cm."""
+    both = {"standard": 0.5, "equivariant": 0.5}
+    records = []
+    for variant in ("none", "perception_bias:0.5", "perception_bias:1"):
+        records += make_cell(both, variant=variant)
+        for agent in both if variant != "perception_bias:0.5" else ():
+            (good,) = make_cell({agent: 1.0}, seeds=1, variant=variant)
+            records.append(make_record(good.evaluations, agent=agent, seed=5, variant=variant))
+    near, far = view_of(with_policies(records, 6)).findings.of(in_which_world.SECTION).errors
+    assert near.success == far.success == both
 
 
 def test_places_with_one_distance_each_have_rows_of_their_own():
