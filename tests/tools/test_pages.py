@@ -15,10 +15,11 @@ from tools.pages import (
     sides,
     steered,
     tuning,
+    words,
 )
 from tools.pages.marks import BEGIN, END, with_tables
 
-TOOLS = (audit, base_policies, free_bias, minima, next_designs, sides, steered, tuning)
+TOOLS = (audit, base_policies, free_bias, minima, next_designs, sides, steered, tuning, words)
 
 
 @pytest.fixture
