@@ -92,7 +92,7 @@ class Seen(SymmetricTask):
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
         # No cloud has points of table, ground and robot, and drawing them would take most of the
-        # time. The robot hides what is behind it: its hulls do so, which have few triangles.
+        # time. The robot hides what is behind it, so its hulls are drawn: they have few triangles.
         self._for_cameras = {}
         if not is_batched(self.scene):
             # On a GPU ManiSkill moves one drawn part of each body, and cannot hide it later.
@@ -104,7 +104,7 @@ class Seen(SymmetricTask):
             for body in link._objs:
                 mesh = body.entity.find_component_by_type(RenderBodyComponent)
                 shapes = body.collision_shapes
-                # The boxes of fingers would hide more.
+                # Fingers collide as boxes, which would hide more.
                 convex = {isinstance(shape, PhysxCollisionShapeConvexMesh) for shape in shapes}
                 if mesh and convex == {True}:
                     hulls = hulls_of(shapes)

@@ -90,7 +90,7 @@ def world_of(kind: str, tables: Sequence[Table], agents: Sequence[str]) -> World
     used = [table for table in tables if wanted <= table.decisive]
     names = [agent for agent in agents if agent in wanted]
     success = {
-        agent: success_in(used, agent)
+        agent: fmean(fmean(_of(table, agent).values()) for table in used)
         for agent in (BASE, *names)
         if all(table.row_of(agent) for table in used)
     }
@@ -98,12 +98,6 @@ def world_of(kind: str, tables: Sequence[Table], agents: Sequence[str]) -> World
     tops = [agent for agent in names if success[agent] == top]
     best = [a for a in names if a in tops or not any(_above(used, one, a) for one in tops)]
     return World(kind, used, success, best)
-
-
-def success_in(tables: Sequence[Table], agent: str) -> float:
-    """Final success, mean over base policies, then over the cells that have the agent."""
-    rows = (table.row_of(agent) for table in tables)
-    return fmean(fmean(row.by_policy("success").values()) for row in rows if row)
 
 
 def _above(tables: Sequence[Table], first: str, second: str) -> bool:

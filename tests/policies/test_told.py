@@ -138,7 +138,7 @@ def test_without_words_it_is_the_ordinary_policy():
     assert not torch.equal(alone.decode(obs, noise), ordinary.decode(obs, noise))
 
 
-def directions(sentences):
+def unit_vectors(sentences):
     """Their embeddings, of length 1."""
     embedded = torch.stack([words.embedding(sentence) for sentence in sentences])
     assert torch.allclose(embedded.abs().sum(dim=1), torch.tensor(4.0))
@@ -147,9 +147,9 @@ def directions(sentences):
 
 @pytest.mark.parametrize("held_out", [False, True])
 def test_wordings_are_nearer_within_a_task_than_between_tasks(held_out):
-    known = {task: directions(words.sentences(task)) for task in TASKS}
+    known = {task: unit_vectors(words.sentences(task)) for task in TASKS}
     for task in TASKS:
-        own = directions(words.sentences(task, held_out))
+        own = unit_vectors(words.sentences(task, held_out))
         near = {other: (own @ known[other].T).mean() for other in TASKS}
         others = [value for other, value in near.items() if other != task]
         assert near[task] > 0.1 + sum(others) / len(others)
@@ -186,7 +186,7 @@ def test_the_sentences():
             # This refuses directions of the plane, too.
             words.check_instruction(sentence)
         # Whatever order its words have, no held-out wording is one of the training.
-        told, new = (directions(words.sentences(task, held_out)) for held_out in (False, True))
+        told, new = (unit_vectors(words.sentences(task, held_out)) for held_out in (False, True))
         assert (new @ told.T).max() < 0.99
         # As the file says.
         known = {

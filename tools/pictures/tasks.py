@@ -120,7 +120,8 @@ def worlds_picture(task: str, world: str, seed: int = 1, steps: int = 8) -> np.n
 
 def _seen(env: SymmetricTask) -> np.ndarray:
     if isinstance(env, Seen):
-        return _view(env._observe_task()["cloud_xy"].view(-1, 2).numpy())
+        cloud = env.get_obs()[0, env.observation_layout.cloud.columns]
+        return _view(cloud[:, :2].numpy())
     if isinstance(env, InHand):
         distance = env.distances()[0]
         light = torch.where(distance > 0, (1.2 - distance / DEEP).clamp(0.2, 1), 0)
@@ -160,9 +161,10 @@ def picture_of(tasks: Sequence[str]) -> np.ndarray:
     """What the command line asks for, uint8."""
     if not tasks:
         return contact_sheet()
-    if unseen := [task for task in tasks if len(tasks) > 1 and not task_class(task).is_seen()]:
-        raise UserError(f"no camera sees {unseen[0]}: name one task, or tasks that cameras see")
     if len(tasks) > 1:
+        for task in tasks:
+            if not task_class(task).is_seen():
+                raise UserError(f"no camera sees {task}: name one task, or tasks that cameras see")
         return np.concatenate([worlds_picture(task, "actuator_offset:0.5") for task in tasks])
     (task,) = tasks
     kind = task_class(task)
