@@ -24,7 +24,7 @@ from PIL import Image, ImageDraw
 from symsteer.bench.runs.film import CAMERA, SIZE, captioned
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.clouds import CAMERAS, PIXELS, Seen
+from symsteer.bench.tasks.clouds import CAMERAS, PIXELS
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.heights import Above
 from symsteer.bench.tasks.in_hand import InHand
@@ -119,9 +119,8 @@ def worlds_picture(task: str, world: str, seed: int = 1, steps: int = 8) -> np.n
 
 
 def _seen(env: SymmetricTask) -> np.ndarray:
-    if isinstance(env, Seen):
-        cloud = env.get_obs()[0, env.observation_layout.cloud.columns]
-        return _view(cloud[:, :2].numpy())
+    if cloud := env.observation_layout.cloud:
+        return _view(env.get_obs()[0, cloud.columns][:, :2].numpy())
     if isinstance(env, InHand):
         distance = env.distances()[0]
         light = torch.where(distance > 0, (1.2 - distance / DEEP).clamp(0.2, 1), 0)
