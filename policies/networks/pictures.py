@@ -30,6 +30,9 @@ of them."""
 SHRINK = 4
 """Pixels of the picture to a place of the last convolution."""
 
+LEAST_SCALE = 1e-3
+"""Of a channel that shows nothing in the demonstrations."""
+
 
 class PictureConvolution(nn.Module):
     """A convolution between fields over the plane.
@@ -138,6 +141,11 @@ class PictureEncoder(KeypointEncoder):
 
     def seen_values(self, obs: torch.Tensor) -> torch.Tensor:
         return self.picture.of(obs).flatten(2)
+
+    def scale_of(self, values: torch.Tensor, largest: torch.Tensor) -> torch.Tensor:
+        # Most pixels are empty. With the largest value, of a body that is lifted, those that lie
+        # would be so small that no weight tells them from the table.
+        return values.square().mean(dim=(0, 2)).sqrt().clamp_min(LEAST_SCALE)
 
     def logits(self, picture: torch.Tensor) -> torch.Tensor:
         """How much each place of ``picture [B, channels, side, side]`` is looked at.

@@ -243,7 +243,9 @@ def test_relative_actions_of_a_plain_network_know_no_direction() -> None:
 
 def test_what_a_picture_tells_has_unit_size() -> None:
     policy = fit("edp", count=4)
-    known = policy.normalized_observation(policy.see(observe(36)[0].float()))
+    obs = observe(36)[0].float()
+    assert float(policy.eyes.scale) == pytest.approx(SEEN.picture.of(obs).max())
+    known = policy.normalized_observation(policy.see(obs))
     told = known[:, policy.eyes.start : policy.eyes.start + policy.eyes.told.dim]
     assert 0.5 < told.abs().max() <= 2.5
 
