@@ -53,3 +53,15 @@ def test_files_that_are_no_results(tool, content, tmp_path, written, capsys):
 def test_tables_are_written_between_the_marks():
     page = f"before\n{BEGIN}old\n{END}after\n"
     assert with_tables(page, "new", "page.md") == f"before\n{BEGIN}\nnew\n\n{END}after\n"
+
+
+def test_of_an_audited_cell_the_last_summary_counts():
+    def row(variant, task="B", embodiment="floating", defect=0.0):
+        fields = {"task": task, "embodiment": embodiment, "group": "C8", "variant": variant}
+        return fields | {"decision": defect}
+
+    others = [row("none", task="A"), row("none", embodiment="panda")]
+    rows = [row("none"), row("wind:1"), *others]
+    rows += [row("wind:0.75"), row("wind:1", defect=0.3), row("gain:10"), row("gain:9")]
+    own = [row("none"), row("gain:9"), row("gain:10"), row("wind:0.75"), row("wind:1", defect=0.3)]
+    assert audit.in_order(rows) == [*own, *others]

@@ -3,7 +3,8 @@
 python -m tools.pages.audit                     # from the committed summary
 python -m tools.pages.audit OUT/summary.json    # replaces the committed summary first
 
-The committed summary is leaderboard/results/audit/summary.json.
+Of a cell that several summaries have, the last one counts. The committed summary is
+leaderboard/results/audit/summary.json.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.tables import markdown
 from symsteer.terminal import complain
+from symsteer.variant import UNBROKEN
 from tools.pages.marks import CHECKOUT, check_checkout, with_tables
 
 PAGE = CHECKOUT / "docs" / "audit.md"
@@ -37,6 +39,8 @@ SUMMARY = CHECKOUT / "leaderboard" / "results" / "audit" / "summary.json"
 TASK_PAGES = CHECKOUT / "docs" / "tasks"
 MARK = "<!-- audit:{} -->\n"
 """Line of a task's page after which everything is generated."""
+CELL = ("task", "embodiment", "group", "variant")
+"""What names a row of a summary."""
 GRADES = ((0.01, "near exact"), (0.05, "close"), (0.15, "rough"))
 """Limits of the defect of a decision."""
 
@@ -174,11 +178,24 @@ def read_summary(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def in_order(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Each cell once: places as they come first, the unbroken variant, the others by strength."""
+    cells = {tuple(row[name] for name in CELL): row for row in rows}
+    places = list(dict.fromkeys((task, embodiment, group) for task, embodiment, group, _ in cells))
+
+    def order(cell: tuple[str, str, str, str]) -> tuple[int, bool, str, float]:
+        name, _, strength = cell[3].partition(":")
+        return places.index(cell[:3]), name != UNBROKEN, name, float(strength or 0)
+
+    return [cells[cell] for cell in sorted(cells, key=order)]
+
+
 def main(arguments: Sequence[str]) -> int:
     """Write the tables of the pages; returns the exit code."""
     try:
         check_checkout(PAGE)
-        rows = [row for path in arguments or [str(SUMMARY)] for row in read_summary(Path(path))]
+        paths = arguments or [str(SUMMARY)]
+        rows = in_order(row for path in paths for row in read_summary(Path(path)))
         pages = {PAGE: generate(PAGE.read_text(), rows)}
         pages[VARIANTS_PAGE] = with_tables(
             VARIANTS_PAGE.read_text(), levels(rows), "docs/variants.md"
