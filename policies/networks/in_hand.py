@@ -86,16 +86,12 @@ class HandEncoder(PictureEncoder):
         fields += [Field(f"shape{j}", j, 2 * self.keypoints) for j in PLANAR]
         return [*fields, Field("shape4", 4, self.keypoints)]
 
-    def scale_of(self, values: torch.Tensor, largest: torch.Tensor) -> torch.Tensor:
-        # Other than a picture from above, most of it shows something.
-        return largest
-
-    def sizes(self, largest: torch.Tensor) -> torch.Tensor:
+    def sizes(self) -> torch.Tensor:
         sizes = torch.ones(self.told.dim)
         for field in self.told.fields:
             if field.name.startswith("camera") or field.name.endswith("distance"):
                 # Half of the largest distance: no vector in space is longer than 2 of it.
-                sizes[self.told.slice(field.name)] = float(largest) / 2
+                sizes[self.told.slice(field.name)] = float(self.scale) / 2
         return sizes
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:

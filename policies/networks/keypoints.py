@@ -44,7 +44,7 @@ class KeypointEncoder(nn.Module, abc.ABC):
         told: geometry of what is told: for each keypoint its mean place in metres and, there, the
             mean of each value; then the shapes.
         layout: the same in its place in the observation.
-        scale: what has unit size for the network that sees each value, ``[values]``.
+        scale: the largest magnitude of each value, ``[values]``.
     """
 
     scale: torch.Tensor
@@ -113,10 +113,8 @@ class KeypointEncoder(nn.Module, abc.ABC):
             obs: demonstrated observations.
             rest: normaliser of the other fields.
         """
-        values = self.seen_values(obs)
-        largest = values.abs().amax(dim=(0, 2)).clamp_min(MINIMUM_RANGE)
-        self.scale.copy_(self.scale_of(values, largest))
-        sizes = self.sizes(largest)
+        self.scale.copy_(self.seen_values(obs).abs().amax(dim=(0, 2)).clamp_min(MINIMUM_RANGE))
+        sizes = self.sizes()
 
         def around(values: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
             return torch.cat([values[: self.start], told.to(values), values[self.start :]])
@@ -128,17 +126,13 @@ class KeypointEncoder(nn.Module, abc.ABC):
             around(rest.deviation, sizes),
         )
 
-    def scale_of(self, values: torch.Tensor, largest: torch.Tensor) -> torch.Tensor:
-        """The scale for demonstrated ``values [M, values, places]``, whose largest are given."""
-        return largest
-
-    def sizes(self, largest: torch.Tensor) -> torch.Tensor:
+    def sizes(self) -> torch.Tensor:
         """What has unit size for the networks of what is told, ``[told.dim]``."""
         sizes = torch.full((self.told.dim,), REACH / self.unit)
         for field in self.told.fields:
             _, _, part = field.name.partition("_")
             if part in self.values:
-                sizes[self.told.slice(field.name)] = float(largest[self.values.index(part)])
+                sizes[self.told.slice(field.name)] = float(self.scale[self.values.index(part)])
             elif part:
                 sizes[self.told.slice(field.name)] = REACH
         return sizes

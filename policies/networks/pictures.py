@@ -1,7 +1,11 @@
 """An encoder of pictures from above that commutes with a group of rotations.
 
     picture --convolutions--> regular fields in every place --one more--> a weight for every place
-    keypoint (g, k) = mean of all places under the weights of group element g, channel k
+    keypoint (g, k) = mean of what is shown under the weights of group element g, channel k
+
+A pixel has mass in proportion to its value, and 0 shows nothing. A place lies at the centre of its
+mass, and its weights are multiplied by its mass. So a keypoint lies on bodies from the start, and
+between pixels.
 
 The convolutions are steerable (escnn); over the trivial group they are ordinary. A turned picture
 turns the keypoints and permutes their group elements. Pixels turn into pixels under quarter turns
@@ -30,8 +34,8 @@ of them."""
 SHRINK = 4
 """Pixels of the picture to a place of the last convolution."""
 
-LEAST_SCALE = 1e-3
-"""Of a channel that shows nothing in the demonstrations."""
+LEAST = 1e-6
+"""Mass of an empty place, where one full of the largest values has 1 for each channel."""
 
 
 class PictureConvolution(nn.Module):
@@ -142,11 +146,6 @@ class PictureEncoder(KeypointEncoder):
     def seen_values(self, obs: torch.Tensor) -> torch.Tensor:
         return self.picture.of(obs).flatten(2)
 
-    def scale_of(self, values: torch.Tensor, largest: torch.Tensor) -> torch.Tensor:
-        # Most pixels are empty. With the largest value, of a body that is lifted, those that lie
-        # would be so small that no weight tells them from the table.
-        return values.square().mean(dim=(0, 2)).sqrt().clamp_min(LEAST_SCALE)
-
     def logits(self, picture: torch.Tensor) -> torch.Tensor:
         """How much each place of ``picture [B, channels, side, side]`` is looked at.
 
@@ -160,9 +159,16 @@ class PictureEncoder(KeypointEncoder):
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         picture = self.picture.of(obs)
-        weights = self.logits(picture).softmax(-1)
-        seen = functional.avg_pool2d(picture, SHRINK).flatten(2)
-        return self.tell(weights, _places(self.picture.side // SHRINK, weights), seen)
+        side = self.picture.side
+        mass = (picture / self.scale[:, None, None]).abs().sum(1, keepdim=True)
+        where = _places(side, picture).T.unflatten(1, (side, side))
+        moments = torch.cat([mass, mass * where, mass * picture], dim=1)
+        moments = functional.avg_pool2d(moments, SHRINK).flatten(2)
+        mass = moments[:, :1] + LEAST
+        middle = _places(side // SHRINK, picture).T
+        centre = (moments[:, 1:3] + LEAST * middle) / mass
+        weights = (self.logits(picture) + mass.log()[:, None]).softmax(-1)
+        return self.tell(weights, centre.mT[:, None], moments[:, 3:] / mass)
 
     def expanded(self) -> Self:
         fast = copy.deepcopy(self)

@@ -2,6 +2,8 @@
 
 python -m tools.pages.seen            # from leaderboard/results/seen
 python -m tools.pages.seen RUNS...    # from other runs, a folder or a record each
+
+Audits of base policies are those of leaderboard/results/seen-audit/summary.json.
 """
 
 from __future__ import annotations
@@ -11,7 +13,9 @@ import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from symsteer.bench.audit.report import percent
 from symsteer.errors import UserError
 from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT
 from symsteer.leaderboard.pairs import advantage
@@ -23,11 +27,13 @@ from symsteer.leaderboard.statistics import Interval, Sample, stratified_bootstr
 from symsteer.leaderboard.text import NOTHING, code, difference, number
 from symsteer.tables import markdown
 from symsteer.variant import UNBROKEN
+from tools.pages.audit import read_summary
 from tools.pages.marks import CHECKOUT, write_tables
 from tools.pages.minima import spread
 
 PAGE = CHECKOUT / "docs" / "seen.md"
 RECORDS = RESULTS / "seen"
+AUDITS = RESULTS / "seen-audit" / "summary.json"
 
 WAYS = {"Seen": "a cloud of points", "Height": "heights from above", "Hand": "from the hand"}
 """What a policy sees, by how the names of its tasks begin; else poses."""
@@ -35,6 +41,7 @@ WAYS = {"Seen": "a cloud of points", "Height": "heights from above", "Hand": "fr
 TASKS = ("PushCube-v1", "PickCube-v1")
 """How the names of the tasks end."""
 
+TURNED = "camera_rotation:1"
 ASIDE = ("perception_bias:1", "actuator_offset:0.5")
 """Worlds in which something is displaced to one side."""
 
@@ -50,8 +57,12 @@ def way_of(task: str) -> str:
     return next((way for begin, way in WAYS.items() if task.startswith(begin)), "poses")
 
 
-def render(runs: Sequence[Run]) -> str:
-    """All tables, in markdown: base policies, success of agents, three differences.
+def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> str:
+    """All tables, in markdown: base policies, their audits, agents, three differences.
+
+    Args:
+        runs: finished ones.
+        audits: rows of the summary of an audit.
 
     Raises:
         UserError: if two tables of runs are of one task and world.
@@ -66,6 +77,8 @@ def render(runs: Sequence[Run]) -> str:
         )
     parts = (
         ("", base_policies(tables)),
+        ("Defects of the base policies of seed 140", audited(audits)),
+        ("Seconds of a run of 24,000 steps", seconds(worlds)),
         ("Success in the last fifth of the steps", success(worlds)),
         (f"Success: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "success")),
         (f"Area: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "auc")),
@@ -99,6 +112,40 @@ def base_policies(tables: Sequence[Table]) -> str:
         )
     heads = ["task", "sees", "demonstrations", "trainings", "success [lowest, highest]"]
     return markdown([*heads, "seconds of a training", "parameters"], rows, left=2)
+
+
+def audited(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Defects of a decision by task: of the object's motion, and of what is observed by world."""
+    worlds = (UNBROKEN, ASIDE[0], TURNED)
+    cells = {(row["task"], row["variant"]): row for row in rows}
+    tasks = sorted({task for task, _ in cells}, key=lambda task: (_rank(way_of(task)), task))
+    lines = [
+        [
+            way_of(task),
+            code(task),
+            percent(cells[task, UNBROKEN]["object"]),
+            *(percent(cells[task, world]["observation"]) for world in worlds),
+        ]
+        for task in tasks
+    ]
+    heads = ["object", *(f"observed, {code(world)}" for world in worlds)]
+    return markdown(["sees", "task", *heads], lines, left=2)
+
+
+def seconds(tables: Sequence[Table]) -> str:
+    """Of a run of each learner, over all worlds, by task."""
+    spent: dict[str, dict[str, list[float]]] = {}
+    for table in tables:
+        for agent in LEARNERS:
+            row = table.row_of(agent)
+            runs = row.finished if row else []
+            times = [run.record.wall_clock.total for run in runs]
+            spent.setdefault(table.key.task, {}).setdefault(agent, []).extend(times)
+    lines = [
+        [way_of(task), code(task), *(f"{statistics.mean(times):.0f}" for times in own.values())]
+        for task, own in sorted(spent.items(), key=lambda cell: (_rank(way_of(cell[0])), cell[0]))
+    ]
+    return markdown(["sees", "task", *map(code, LEARNERS)], lines, left=2)
 
 
 def success(tables: Sequence[Table]) -> str:
@@ -176,7 +223,9 @@ def _mean(cells: Cells) -> Interval | None:
 def main(arguments: Sequence[str]) -> int:
     """Write the tables."""
     places = [Path(argument) for argument in arguments] or [RECORDS]
-    return write_tables(PAGE, lambda: render(load_runs(places, area_from="first update")))
+    return write_tables(
+        PAGE, lambda: render(load_runs(places, area_from="first update"), read_summary(AUDITS))
+    )
 
 
 if __name__ == "__main__":
