@@ -34,7 +34,7 @@ of them."""
 SHRINK = 4
 """Pixels of the picture to a place of the last convolution."""
 
-LEAST = 1e-6
+LEAST = 1e-9
 """Mass of an empty place, where one full of the largest values has 1 for each channel."""
 
 
@@ -161,14 +161,13 @@ class PictureEncoder(KeypointEncoder):
         picture = self.picture.of(obs)
         side = self.picture.side
         mass = (picture / self.scale[:, None, None]).abs().sum(1, keepdim=True)
-        where = _places(side, picture).T.unflatten(1, (side, side))
+        where = _pixels(side, picture)
         moments = torch.cat([mass, mass * where, mass * picture], dim=1)
         moments = functional.avg_pool2d(moments, SHRINK).flatten(2)
         mass = moments[:, :1] + LEAST
-        middle = _places(side // SHRINK, picture).T
-        centre = (moments[:, 1:3] + LEAST * middle) / mass
         weights = (self.logits(picture) + mass.log()[:, None]).softmax(-1)
-        return self.tell(weights, centre.mT[:, None], moments[:, 3:] / mass)
+        means = moments[:, 1:] / mass
+        return self.tell(weights, means[:, :2].mT[:, None], means[:, 2:])
 
     def expanded(self) -> Self:
         fast = copy.deepcopy(self)
@@ -182,9 +181,7 @@ def _channels_last(x: torch.Tensor) -> torch.Tensor:
     return x.contiguous(memory_format=torch.channels_last)
 
 
-def _places(side: int, like: torch.Tensor) -> torch.Tensor:
-    """Centres of the places of a picture, rows from +y to -y, ``[side * side, 2]`` in [-1, 1]."""
+def _pixels(side: int, like: torch.Tensor) -> torch.Tensor:
+    """Centres of pixels ``[2, side, side]``, rows from +y to -y, in [-1, 1]."""
     line = (torch.arange(side, device=like.device, dtype=like.dtype) + 0.5) * (2 / side) - 1
-    return torch.stack([line.expand(side, side), -line[:, None].expand(side, side)], -1).flatten(
-        0, 1
-    )
+    return torch.stack([line.expand(side, side), -line[:, None].expand(side, side)])
