@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from symsteer.bench.audit.report import percent
+from symsteer.bench.audit.report import EXACT, percent
 from symsteer.errors import UserError
 from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT
 from symsteer.leaderboard.pairs import advantage
@@ -124,7 +124,7 @@ def audited(rows: Sequence[Mapping[str, Any]]) -> str:
             way_of(task),
             code(task),
             percent(cells[task, UNBROKEN]["object"]),
-            *(percent(cells[task, world]["observation"]) for world in worlds),
+            *(_beyond_rounding(cells[task, world]["observation"]) for world in worlds),
         ]
         for task in tasks
     ]
@@ -191,6 +191,10 @@ def differences(tables: Sequence[Table], first: str, second: str, measure: str) 
             )
     heads = [name.removesuffix("-v1") for name in TASKS]
     return markdown(["sees", "world", *heads, "both", "both, less unbroken"], rows, left=2)
+
+
+def _beyond_rounding(defect: Sequence[float]) -> str:
+    return percent(defect) if max(defect) > EXACT else "0"
 
 
 def _rank(way: str) -> int:
