@@ -4,7 +4,7 @@
     keypoint (g, k) = mean of what is shown under the weights of group element g, channel k
 
 A pixel has mass in proportion to its value, and 0 shows nothing. A place lies at the centre of its
-mass, and its weights are multiplied by its mass. So a keypoint lies on bodies from the start, and
+mass, and its weights are multiplied by its mass. So a keypoint lies on bodies from the start, also
 between pixels.
 
 The convolutions are steerable (escnn); over the trivial group they are ordinary. A turned picture

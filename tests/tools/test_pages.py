@@ -64,4 +64,5 @@ def test_of_an_audited_cell_the_last_summary_counts():
     rows = [row("none"), row("wind:1"), *others]
     rows += [row("wind:0.75"), row("wind:1", defect=0.3), row("gain:10"), row("gain:9")]
     own = [row("none"), row("gain:9"), row("gain:10"), row("wind:0.75"), row("wind:1", defect=0.3)]
-    assert audit.in_order(rows) == [*own, *others]
+    more = [row("wind:1.5..2.5"), row("wind:2+gain:1")]
+    assert audit.in_order([*more, *rows]) == [*own, *more, *others]
