@@ -185,9 +185,9 @@ def in_order(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
     def order(cell: tuple[str, str, str, str]) -> tuple[int, bool, str, float]:
         name, _, strength = cell[3].partition(":")
-        # A joined variant has more than a number here.
-        number = re.match(r"\d*\.?\d*", strength)
-        return places.index(cell[:3]), name != UNBROKEN, name, float((number and number[0]) or 0)
+        # Joined and moving variants have more than one number.
+        first = re.split(r"[^\d.]|\.\.", strength)[0]
+        return places.index(cell[:3]), name != UNBROKEN, name, float(first or 0)
 
     return [cells[cell] for cell in sorted(cells, key=order)]
 

@@ -78,7 +78,7 @@ def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> str:
     parts = (
         ("", base_policies(tables)),
         ("Defects of the base policies of seed 140", audited(audits)),
-        ("Seconds of a run of 24,000 steps", seconds(worlds)),
+        ("Seconds of a run of 24,000 steps (median)", seconds(worlds)),
         ("Success in the last fifth of the steps", success(worlds)),
         (f"Success: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "success")),
         (f"Area: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "auc")),
@@ -133,7 +133,7 @@ def audited(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def seconds(tables: Sequence[Table]) -> str:
-    """Of a run of each learner, over all worlds, by task."""
+    """Of a run of each learner, the median over all worlds, by task; some runs were paused."""
     spent: dict[str, dict[str, list[float]]] = {}
     for table in tables:
         for agent in LEARNERS:
@@ -142,7 +142,11 @@ def seconds(tables: Sequence[Table]) -> str:
             times = [run.record.wall_clock.total for run in runs]
             spent.setdefault(table.key.task, {}).setdefault(agent, []).extend(times)
     lines = [
-        [way_of(task), code(task), *(f"{statistics.mean(times):.0f}" for times in own.values())]
+        [
+            way_of(task),
+            code(task),
+            *(f"{statistics.median(t):.0f}" if t else NOTHING for t in own.values()),
+        ]
         for task, own in sorted(spent.items(), key=lambda cell: (_rank(way_of(cell[0])), cell[0]))
     ]
     return markdown(["sees", "task", *map(code, LEARNERS)], lines, left=2)
