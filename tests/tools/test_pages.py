@@ -12,6 +12,7 @@ from tools.pages import (
     marks,
     minima,
     next_designs,
+    seen,
     sides,
     steered,
     tuning,
@@ -19,7 +20,18 @@ from tools.pages import (
 )
 from tools.pages.marks import BEGIN, END, with_tables
 
-TOOLS = (audit, base_policies, free_bias, minima, next_designs, sides, steered, tuning, words)
+TOOLS = (
+    audit,
+    base_policies,
+    free_bias,
+    minima,
+    next_designs,
+    seen,
+    sides,
+    steered,
+    tuning,
+    words,
+)
 
 
 @pytest.fixture
