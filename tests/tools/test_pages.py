@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from symsteer.errors import UserError
 from symsteer.files import write_together
 from tools.pages import (
     audit,
@@ -65,6 +66,15 @@ def test_files_that_are_no_results(tool, content, tmp_path, written, capsys):
 def test_tables_are_written_between_the_marks():
     page = f"before\n{BEGIN}old\n{END}after\n"
     assert with_tables(page, "new", "page.md") == f"before\n{BEGIN}\nnew\n\n{END}after\n"
+    assert with_tables(page * 2, ["a", "b"], "page.md") == "".join(
+        f"before\n{BEGIN}\n{new}\n\n{END}after\n" for new in "ab"
+    )
+
+
+@pytest.mark.parametrize("page", ["no mark", f"one pair\n{BEGIN}{END}", f"{BEGIN}{END}{BEGIN}"])
+def test_pages_without_all_marks_are_refused(page):
+    with pytest.raises(UserError, match=r"^page\.md lacks the marks .* restore the page$"):
+        with_tables(page, ["a", "b"], "page.md")
 
 
 def test_of_an_audited_cell_the_last_summary_counts():

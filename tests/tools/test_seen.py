@@ -54,8 +54,9 @@ def rows_of(table: str) -> list[list[str]]:
 def test_tables_are_by_task_and_over_both(tmp_path):
     tasks = "PushCube-v1", "PickCube-v1", "HeightPushCube-v1"
     runs = runs_of(tmp_path, *tasks)
-    tables = (rows_of(table) for table in render(runs, audits_of(*tasks)).split("\n\n")[::2])
-    policies, audits, seconds, success, strict, area, approximate = tables
+    answers, tables = render(runs, audits_of(*tasks))
+    parts = (rows_of(table) for table in tables.split("\n\n")[::2])
+    policies, audits, seconds, success, strict, area, approximate = parts
     assert [row[:2] for row in policies] == [
         ["`HeightPushCube-v1`", "heights from above"],
         ["`PickCube-v1`", "poses"],
@@ -76,6 +77,11 @@ def test_tables_are_by_task_and_over_both(tmp_path):
     assert {tuple(row[:2]) for row in area} == found.keys()
     freed = {tuple(row[:2]): row[2].split()[0] for row in approximate}
     assert freed["poses", "`perception_bias:1`"] == "+0.50"
+    # Of poses both tasks are here, of heights one; no run saw a turned camera.
+    answered = [[cell.split()[0] for cell in row[1:]] for row in rows_of(answers)]
+    assert {heights for _, heights in answered} == {NOTHING}
+    found = ["+0.25", f"{MINUS}0.38", f"{MINUS}0.62", NOTHING, "0.00", "+0.25"]
+    assert [poses for poses, _ in answered[1:]] == found
 
 
 def test_runs_of_two_kinds_are_not_mixed(tmp_path):

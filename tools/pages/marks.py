@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from symsteer.errors import UserError
@@ -13,24 +13,26 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
 
 
-def with_tables(page: str, tables: str, name: str) -> str:
+def with_tables(page: str, tables: str | Sequence[str], name: str) -> str:
     """Replace what stands between the marks of a page.
 
     Args:
         page: its text.
-        tables: markdown.
+        tables: markdown; a text for each pair of marks, where there are several.
         name: of the page, for messages.
 
     Raises:
         UserError: the page lacks the marks.
     """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
+    texts = [tables] if isinstance(tables, str) else tables
+    new, *parts = page.split(BEGIN)
+    if len(parts) != len(texts) or not all(END in part for part in parts):
         raise UserError(
             f"{name} lacks the marks {BEGIN.strip()} and {END.strip()}; restore the page"
         )
-    return f"{before}{BEGIN}\n{tables.strip()}\n\n{END}{after}"
+    for text, part in zip(texts, parts, strict=True):
+        new += f"{BEGIN}\n{text.strip()}\n\n{END}{part.partition(END)[2]}"
+    return new
 
 
 def check_checkout(page: Path) -> None:
@@ -43,12 +45,12 @@ def check_checkout(page: Path) -> None:
         raise UserError(f"there is no {page}: pages can be written in a checkout of SymSteer only")
 
 
-def write_tables(page: Path, render: Callable[[], str]) -> int:
+def write_tables(page: Path, render: Callable[[], str | Sequence[str]]) -> int:
     """Write what ``render`` gives between the marks of a page of ``docs``.
 
     Args:
         page: its file.
-        render: gives markdown, or raises a UserError.
+        render: gives markdown, a text for each pair of marks, or raises a UserError.
 
     Returns:
         The exit code.

@@ -45,11 +45,16 @@ TURNED = "camera_rotation:1"
 ASIDE = ("perception_bias:1", "actuator_offset:0.5")
 """Worlds in which something is displaced to one side."""
 
+DISPLACED = " and ".join(ASIDE)
+
 APPROXIMATE = "residual-pathway"
 LEARNERS = (STANDARD, STRICT, APPROXIMATE)
 
 Cells = dict[str, Mapping[Pair, Sample]]
 """Differences of pairs of runs, by task."""
+
+Ways = dict[str, dict[str, Cells]]
+"""The same by what is seen and world."""
 
 
 def way_of(task: str) -> str:
@@ -57,8 +62,10 @@ def way_of(task: str) -> str:
     return next((way for begin, way in WAYS.items() if task.startswith(begin)), "poses")
 
 
-def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> str:
-    """All tables, in markdown: base policies, their audits, agents, three differences.
+def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    """In markdown, the answers to the page's questions, and all other tables.
+
+    The latter are of base policies, their audits, agents, and three differences.
 
     Args:
         runs: finished ones.
@@ -75,19 +82,41 @@ def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> str:
             f"there are several kinds of runs of {twice[0][0]} in the world {twice[0][1]}, with "
             "other settings; name the folders of one kind"
         )
+    strict = by_way(worlds, STRICT, STANDARD, "success")
+    area = by_way(worlds, STRICT, STANDARD, "auc")
+    approximate = by_way(worlds, APPROXIMATE, STRICT, "success")
     parts = (
         ("", base_policies(tables)),
         ("Defects of the base policies of seed 140", audited(audits)),
         ("Seconds of a run of 24,000 steps (median)", seconds(worlds)),
         ("Success in the last fifth of the steps", success(worlds)),
-        (f"Success: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "success")),
-        (f"Area: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "auc")),
-        (
-            f"Success: {APPROXIMATE} minus {STRICT}",
-            differences(worlds, APPROXIMATE, STRICT, "success"),
-        ),
+        (f"Success: {STRICT} minus {STANDARD}", differences(strict)),
+        (f"Area: {STRICT} minus {STANDARD}", differences(area)),
+        (f"Success: {APPROXIMATE} minus {STRICT}", differences(approximate)),
     )
-    return "\n\n".join(f"**{head}**\n\n{table}" if head else table for head, table in parts)
+    return answers(strict, area, approximate), "\n\n".join(
+        f"**{head}**\n\n{table}" if head else table for head, table in parts
+    )
+
+
+def answers(strict: Ways, area: Ways, approximate: Ways) -> str:
+    """The questions of the plan, over both tasks, with a column for each way to see."""
+    versus = f"{code(STRICT)} minus {code(STANDARD)}"
+    freed = f"{code(APPROXIMATE)} minus {code(STRICT)}"
+    questions = (
+        (f"1. {versus}, unbroken: area", area, UNBROKEN, False),
+        ("the same: success", strict, UNBROKEN, False),
+        ("2. where something is displaced: success", strict, DISPLACED, False),
+        ("the same, less unbroken", strict, DISPLACED, True),
+        ("3. with a turned camera, less unbroken: success", strict, TURNED, True),
+        (f"4. {freed}, unbroken: success", approximate, UNBROKEN, False),
+        ("where something is displaced", approximate, DISPLACED, False),
+    )
+    rows = [
+        [question, *(_over_both(worlds, world, beyond) for worlds in found.values())]
+        for question, found, world, beyond in questions
+    ]
+    return markdown(["question", *strict], rows, left=1)
 
 
 def base_policies(tables: Sequence[Table]) -> str:
@@ -163,36 +192,34 @@ def success(tables: Sequence[Table]) -> str:
     return markdown(["sees", "task", "world", *map(code, (BASE, *LEARNERS))], rows, left=3)
 
 
-def differences(tables: Sequence[Table], first: str, second: str, measure: str) -> str:
-    """Of two agents, in pairs of runs on one base policy, by what is seen and world.
+def by_way(tables: Sequence[Table], first: str, second: str, measure: str) -> Ways:
+    """Of two agents, in pairs of runs on one base policy: differences by what is seen and world.
 
-    In each task, over both, and over both less that of the unbroken world. A last row for what is
-    seen has the mean over the two worlds of `ASIDE`.
+    The last world is the mean over the two of `ASIDE`.
     """
-    found: dict[str, dict[str, Cells]] = {}
+    found: Ways = {}
     for table in tables:
         cells = found.setdefault(way_of(table.key.task), {}).setdefault(table.key.variant, {})
         cells[table.key.task] = advantage(table, first, second, measure)
-    rows = []
-    for way in sorted(found, key=_rank):
-        worlds = dict(found[way])
+    for worlds in found.values():
         if {*ASIDE} <= worlds.keys():
-            worlds[" and ".join(ASIDE)] = _combined(worlds[ASIDE[0]], worlds[ASIDE[1]], [0.5, 0.5])
-        for world, cells in worlds.items():
-            by_task = [
-                {task: pairs for task, pairs in cells.items() if task.endswith(name)}
-                for name in TASKS
-            ]
-            beyond = _combined(cells, worlds.get(UNBROKEN, {}), [1, -1])
-            rows.append(
-                [
-                    way,
-                    " and ".join(map(code, world.split(" and "))),
-                    *(difference(_mean(part)) for part in by_task),
-                    difference(_mean(cells)) if all(by_task) else NOTHING,
-                    difference(_mean(beyond)) if all(by_task) and world != UNBROKEN else NOTHING,
-                ]
-            )
+            worlds[DISPLACED] = _combined(worlds[ASIDE[0]], worlds[ASIDE[1]], [0.5, 0.5])
+    return {way: found[way] for way in sorted(found, key=_rank)}
+
+
+def differences(found: Ways) -> str:
+    """By what is seen and world: in each task, over both, over both less the unbroken world."""
+    rows = [
+        [
+            way,
+            " and ".join(map(code, world.split(" and "))),
+            *(difference(_mean(_of_task(cells, name))) for name in TASKS),
+            _over_both(worlds, world),
+            _over_both(worlds, world, beyond=True) if world != UNBROKEN else NOTHING,
+        ]
+        for way, worlds in found.items()
+        for world, cells in worlds.items()
+    ]
     heads = [name.removesuffix("-v1") for name in TASKS]
     return markdown(["sees", "world", *heads, "both", "both, less unbroken"], rows, left=2)
 
@@ -220,6 +247,19 @@ def _combined(one: Cells, other: Cells, factors: Sequence[float]) -> Cells:
         }
         for task, pairs in one.items()
     }
+
+
+def _of_task(cells: Cells, name: str) -> Cells:
+    return {task: pairs for task, pairs in cells.items() if task.endswith(name)}
+
+
+def _over_both(worlds: Mapping[str, Cells], world: str, beyond: bool = False) -> str:
+    """The mean over both tasks, ``beyond`` the unbroken world's or not."""
+    cells = worlds.get(world, {})
+    if not all(_of_task(cells, name) for name in TASKS):
+        return NOTHING
+    unbroken = worlds.get(UNBROKEN, {})
+    return difference(_mean(_combined(cells, unbroken, [1, -1]) if beyond else cells))
 
 
 def _mean(cells: Cells) -> Interval | None:
