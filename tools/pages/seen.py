@@ -46,6 +46,7 @@ ASIDE = ("perception_bias:1", "actuator_offset:0.5")
 """Worlds in which something is displaced to one side."""
 
 DISPLACED = " and ".join(ASIDE)
+"""What the mean over these worlds is called."""
 
 APPROXIMATE = "residual-pathway"
 LEARNERS = (STANDARD, STRICT, APPROXIMATE)
@@ -54,7 +55,7 @@ Cells = dict[str, Mapping[Pair, Sample]]
 """Differences of pairs of runs, by task."""
 
 Ways = dict[str, dict[str, Cells]]
-"""The same by what is seen and world."""
+"""The same, by what is seen, then by world."""
 
 
 def way_of(task: str) -> str:
@@ -63,9 +64,9 @@ def way_of(task: str) -> str:
 
 
 def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
-    """In markdown, the answers to the page's questions, and all other tables.
+    """Two texts in markdown: the answers to the page's questions, and all other tables.
 
-    The latter are of base policies, their audits, agents, and three differences.
+    The others are: base policies, their audits, seconds of a run, success, three differences.
 
     Args:
         runs: finished ones.
@@ -193,9 +194,9 @@ def success(tables: Sequence[Table]) -> str:
 
 
 def by_way(tables: Sequence[Table], first: str, second: str, measure: str) -> Ways:
-    """Of two agents, in pairs of runs on one base policy: differences by what is seen and world.
+    """Differences of two agents, in pairs of runs on one base policy.
 
-    The last world is the mean over the two of `ASIDE`.
+    The last world of each way to see is the mean over the two of `ASIDE`.
     """
     found: Ways = {}
     for table in tables:
@@ -254,7 +255,7 @@ def _of_task(cells: Cells, name: str) -> Cells:
 
 
 def _over_both(worlds: Mapping[str, Cells], world: str, beyond: bool = False) -> str:
-    """The mean over both tasks, ``beyond`` the unbroken world's or not."""
+    """The mean over both tasks; if ``beyond``, less that of the unbroken world."""
     cells = worlds.get(world, {})
     if not all(_of_task(cells, name) for name in TASKS):
         return NOTHING
