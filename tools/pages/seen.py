@@ -17,7 +17,7 @@ from typing import Any
 
 from symsteer.bench.audit.report import EXACT, percent
 from symsteer.errors import UserError
-from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT
+from symsteer.leaderboard.known_agents import BASE, MATCHED, STANDARD, STRICT
 from symsteer.leaderboard.pairs import advantage
 from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.row_numbers import summarize
@@ -50,6 +50,9 @@ DISPLACED = " and ".join(ASIDE)
 
 APPROXIMATE = "residual-pathway"
 LEARNERS = (STANDARD, STRICT, APPROXIMATE)
+"""In every world; `MATCHED` is in the unbroken one alone."""
+
+SHOWN = (BASE, STANDARD, MATCHED, STRICT, APPROXIMATE)
 
 Cells = dict[str, Mapping[Pair, Sample]]
 """Differences of pairs of runs, by task."""
@@ -84,6 +87,7 @@ def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> tuple[st
             "other settings; name the folders of one kind"
         )
     strict = by_way(worlds, STRICT, STANDARD, "success")
+    matched = by_way(worlds, STRICT, MATCHED, "success")
     area = by_way(worlds, STRICT, STANDARD, "auc")
     approximate = by_way(worlds, APPROXIMATE, STRICT, "success")
     parts = (
@@ -95,18 +99,19 @@ def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> tuple[st
         (f"Area: {STRICT} minus {STANDARD}", differences(area)),
         (f"Success: {APPROXIMATE} minus {STRICT}", differences(approximate)),
     )
-    return answers(strict, area, approximate), "\n\n".join(
+    return answers(strict, matched, area, approximate), "\n\n".join(
         f"**{head}**\n\n{table}" if head else table for head, table in parts
     )
 
 
-def answers(strict: Ways, area: Ways, approximate: Ways) -> str:
+def answers(strict: Ways, matched: Ways, area: Ways, approximate: Ways) -> str:
     """The questions of the plan, over both tasks, with a column for each way to see."""
     versus = f"{code(STRICT)} minus {code(STANDARD)}"
     freed = f"{code(APPROXIMATE)} minus {code(STRICT)}"
     questions = (
         (f"1. {versus}, unbroken: area", area, UNBROKEN, False),
         ("the same: success", strict, UNBROKEN, False),
+        (f"success of {code(STRICT)} minus {code(MATCHED)}", matched, UNBROKEN, False),
         ("2. where something is displaced: success", strict, DISPLACED, False),
         ("the same, less unbroken", strict, DISPLACED, True),
         ("3. with a turned camera, less unbroken: success", strict, TURNED, True),
@@ -186,11 +191,11 @@ def success(tables: Sequence[Table]) -> str:
     """Of each agent in each task and world."""
     rows = []
     for table in sorted(tables, key=lambda t: (_rank(way_of(t.key.task)), t.key.task)):
-        shares = (_success(table, agent) for agent in (BASE, *LEARNERS))
+        shares = (_success(table, agent) for agent in SHOWN)
         rows.append(
             [way_of(table.key.task), code(table.key.task), code(table.key.variant), *shares]
         )
-    return markdown(["sees", "task", "world", *map(code, (BASE, *LEARNERS))], rows, left=3)
+    return markdown(["sees", "task", "world", *map(code, SHOWN)], rows, left=3)
 
 
 def by_way(tables: Sequence[Table], first: str, second: str, measure: str) -> Ways:
