@@ -11,13 +11,12 @@ BASE = "base"
 ZERO, CONSTANT = "zero", "golden-ticket"
 """The frozen policy with no noise, and with the best constant one."""
 
-STANDARD, MATCHED, STRICT = "standard", "standard-matched", "equivariant"
-"""Without symmetry, with the channels of the equivariant agent; the same with as many parameters
-as that agent; and the equivariant agent."""
+STANDARD, STRICT = "standard", "equivariant"
+"""Without symmetry, with the channels of the equivariant agent; and the equivariant agent."""
 
-WITHOUT_SYMMETRY = (STANDARD, MATCHED, "augmented")
-"""Rivals without symmetry in their networks. The last is the fair one, which learns from rotated
-data."""
+WITHOUT_SYMMETRY = (STANDARD, "standard-matched", "augmented")
+"""Rivals without symmetry in their networks: `standard`, the same with as many parameters as
+`equivariant`, and the fair one, which learns from rotated data."""
 
 WITH_SYMMETRY = (STRICT, "residual-pathway", "approximate")
 """All of it, and nearly all. The last is that of the first leaderboard, which `residual-pathway`

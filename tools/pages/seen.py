@@ -17,7 +17,7 @@ from typing import Any
 
 from symsteer.bench.audit.report import EXACT, percent
 from symsteer.errors import UserError
-from symsteer.leaderboard.known_agents import BASE, MATCHED, STANDARD, STRICT
+from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT, WITHOUT_SYMMETRY
 from symsteer.leaderboard.pairs import advantage
 from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.row_numbers import summarize
@@ -50,9 +50,12 @@ DISPLACED = " and ".join(ASIDE)
 
 APPROXIMATE = "residual-pathway"
 LEARNERS = (STANDARD, STRICT, APPROXIMATE)
-"""In every world; `MATCHED` is in the unbroken one alone."""
+"""In every world."""
 
-SHOWN = (BASE, STANDARD, MATCHED, STRICT, APPROXIMATE)
+RIVALS = WITHOUT_SYMMETRY[1:]
+"""In the unbroken world alone."""
+
+SHOWN = (BASE, *WITHOUT_SYMMETRY, STRICT, APPROXIMATE)
 
 Cells = dict[str, Mapping[Pair, Sample]]
 """Differences of pairs of runs, by task."""
@@ -87,7 +90,7 @@ def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> tuple[st
             "other settings; name the folders of one kind"
         )
     strict = by_way(worlds, STRICT, STANDARD, "success")
-    matched = by_way(worlds, STRICT, MATCHED, "success")
+    rivals = {name: by_way(worlds, STRICT, name, "success") for name in RIVALS}
     area = by_way(worlds, STRICT, STANDARD, "auc")
     approximate = by_way(worlds, APPROXIMATE, STRICT, "success")
     parts = (
@@ -99,19 +102,22 @@ def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> tuple[st
         (f"Area: {STRICT} minus {STANDARD}", differences(area)),
         (f"Success: {APPROXIMATE} minus {STRICT}", differences(approximate)),
     )
-    return answers(strict, matched, area, approximate), "\n\n".join(
+    return answers(strict, rivals, area, approximate), "\n\n".join(
         f"**{head}**\n\n{table}" if head else table for head, table in parts
     )
 
 
-def answers(strict: Ways, matched: Ways, area: Ways, approximate: Ways) -> str:
+def answers(strict: Ways, rivals: Mapping[str, Ways], area: Ways, approximate: Ways) -> str:
     """The questions of the plan, over both tasks, with a column for each way to see."""
     versus = f"{code(STRICT)} minus {code(STANDARD)}"
     freed = f"{code(APPROXIMATE)} minus {code(STRICT)}"
     questions = (
         (f"1. {versus}, unbroken: area", area, UNBROKEN, False),
         ("the same: success", strict, UNBROKEN, False),
-        (f"success of {code(STRICT)} minus {code(MATCHED)}", matched, UNBROKEN, False),
+        *(
+            (f"success of {code(STRICT)} minus {code(name)}", found, UNBROKEN, False)
+            for name, found in rivals.items()
+        ),
         ("2. where something is displaced: success", strict, DISPLACED, False),
         ("the same, less unbroken", strict, DISPLACED, True),
         ("3. with a turned camera, less unbroken: success", strict, TURNED, True),
