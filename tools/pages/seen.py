@@ -90,7 +90,11 @@ def render(runs: Sequence[Run], audits: Sequence[Mapping[str, Any]]) -> tuple[st
             "other settings; name the folders of one kind"
         )
     strict = by_way(worlds, STRICT, STANDARD, "success")
-    rivals = {name: by_way(worlds, STRICT, name, "success") for name in RIVALS}
+    rivals = {
+        f"{word}, against {code(name)}": by_way(worlds, STRICT, name, measure)
+        for name in RIVALS
+        for word, measure in (("area", "auc"), ("success", "success"))
+    }
     area = by_way(worlds, STRICT, STANDARD, "auc")
     approximate = by_way(worlds, APPROXIMATE, STRICT, "success")
     parts = (
@@ -114,10 +118,7 @@ def answers(strict: Ways, rivals: Mapping[str, Ways], area: Ways, approximate: W
     questions = (
         (f"1. {versus}, unbroken: area", area, UNBROKEN, False),
         ("the same: success", strict, UNBROKEN, False),
-        *(
-            (f"success of {code(STRICT)} minus {code(name)}", found, UNBROKEN, False)
-            for name, found in rivals.items()
-        ),
+        *((f"the same: {head}", found, UNBROKEN, False) for head, found in rivals.items()),
         ("2. where something is displaced: success", strict, DISPLACED, False),
         ("the same, less unbroken", strict, DISPLACED, True),
         ("3. with a turned camera, less unbroken: success", strict, TURNED, True),
