@@ -24,7 +24,7 @@ from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.rows import Table
 from symsteer.leaderboard.runs import Pair, Run, load_runs
 from symsteer.leaderboard.statistics import Interval, Sample, stratified_bootstrap
-from symsteer.leaderboard.text import NOTHING, code, difference, number
+from symsteer.leaderboard.text import NOTHING, code, difference, mark_of, number, stacked
 from symsteer.tables import markdown
 from symsteer.variant import UNBROKEN
 from tools.pages.audit import read_summary
@@ -117,8 +117,8 @@ def answers(strict: Ways, rivals: Mapping[str, Ways], area: Ways, approximate: W
     freed = f"{code(APPROXIMATE)} minus {code(STRICT)}"
     questions = (
         (f"1. {versus}, unbroken: area", area, UNBROKEN, False),
-        ("the same: success", strict, UNBROKEN, False),
-        *((f"the same: {head}", found, UNBROKEN, False) for head, found in rivals.items()),
+        ("success", strict, UNBROKEN, False),
+        *((head, found, UNBROKEN, False) for head, found in rivals.items()),
         ("2. where something is displaced: success", strict, DISPLACED, False),
         ("the same, less unbroken", strict, DISPLACED, True),
         ("3. with a turned camera, less unbroken: success", strict, TURNED, True),
@@ -126,7 +126,7 @@ def answers(strict: Ways, rivals: Mapping[str, Ways], area: Ways, approximate: W
         ("where something is displaced", approximate, DISPLACED, False),
     )
     rows = [
-        [question, *(_over_both(worlds, world, beyond) for worlds in found.values())]
+        [question, *(_on_two_lines(_over_both(ws, world, beyond)) for ws in found.values())]
         for question, found, world, beyond in questions
     ]
     return markdown(["question", *strict], rows, left=1)
@@ -227,8 +227,8 @@ def differences(found: Ways) -> str:
             way,
             " and ".join(map(code, world.split(" and "))),
             *(difference(_mean(_of_task(cells, name))) for name in TASKS),
-            _over_both(worlds, world),
-            _over_both(worlds, world, beyond=True) if world != UNBROKEN else NOTHING,
+            difference(_over_both(worlds, world)),
+            difference(_over_both(worlds, world, beyond=True) if world != UNBROKEN else None),
         ]
         for way, worlds in found.items()
         for world, cells in worlds.items()
@@ -266,13 +266,17 @@ def _of_task(cells: Cells, name: str) -> Cells:
     return {task: pairs for task, pairs in cells.items() if task.endswith(name)}
 
 
-def _over_both(worlds: Mapping[str, Cells], world: str, beyond: bool = False) -> str:
+def _over_both(worlds: Mapping[str, Cells], world: str, beyond: bool = False) -> Interval | None:
     """The mean over both tasks; if ``beyond``, less that of the unbroken world."""
     cells = worlds.get(world, {})
     if not all(_of_task(cells, name) for name in TASKS):
-        return NOTHING
+        return None
     unbroken = worlds.get(UNBROKEN, {})
-    return difference(_mean(_combined(cells, unbroken, [1, -1]) if beyond else cells))
+    return _mean(_combined(cells, unbroken, [1, -1]) if beyond else cells)
+
+
+def _on_two_lines(mean: Interval | None) -> str:
+    return stacked(mean, sign=True, marks=mark_of(mean))
 
 
 def _mean(cells: Cells) -> Interval | None:
