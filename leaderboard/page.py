@@ -144,9 +144,9 @@ def seed_notice(summary: Summary) -> str:
     few = [row for row in ranked if len(row.finished) < MIN_SEEDS]
     if not few:
         return ""
-    which = "No agent here has" if len(few) == len(ranked) else "Not every agent here has"
+    none = len(few) == len(ranked)
     return (
-        f"> **Not ranked.** {which} the {MIN_SEEDS} finished seeds that a ranking needs. Agents "
-        "with fewer are shown in a fixed order. Read the intervals: differences between agents are "
-        "hints, not results."
+        f"> **{'Not' if none else 'Not all'} ranked.** {'No' if none else 'Not every'} agent here "
+        f"has the {MIN_SEEDS} finished seeds that a ranking needs. Agents with fewer are shown in "
+        "a fixed order. Read the intervals: differences between agents are hints, not results."
     )

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from symsteer.leaderboard.statistics import Interval
 
 Values = NDArray[np.float64]
 
-SPLITS = 100
+SPLITS = 1000
 """Halves of the base policies over which a regret is averaged."""
 
 
@@ -77,25 +77,39 @@ def regrets(cells: Sequence[Cell], splits: int = SPLITS, seed: int = 0) -> Regre
 
 
 def _halves(cell: Cell, splits: int, seed: int) -> Values:
-    """``[2, splits * 2, agents]``: below the best agent where it was chosen, and where measured.
+    return _below(cell.values, _orders(tuple(cell.policies), splits, seed))
+
+
+@lru_cache(maxsize=256)
+def _orders(policies: tuple[str, ...], splits: int, seed: int) -> NDArray[np.intp]:
+    """Random orders of base policies, ``[splits, policies]``, cut into halves in the middle.
 
     The same base policies are in the same halves in all cells.
     """
-    generators = [np.random.default_rng([seed, *name.encode()]) for name in cell.policies]
-    order = np.stack([each.random(splits) for each in generators], axis=1).argsort(1)
-    ordered, cut = cell.values[:, order], len(generators) // 2
-    halves = ordered[..., :cut].mean(-1).T, ordered[..., cut:].mean(-1).T
-    found = []
+    generators = [np.random.default_rng([seed, *name.encode()]) for name in policies]
+    return np.stack([each.random(splits) for each in generators], axis=1).argsort(1)
+
+
+def _below(values: Values, orders: NDArray[np.intp]) -> Values:
+    """Below the best agent, chosen and measured on each half: ``[2, ..., splits * 2, agents]``.
+
+    Args:
+        values: ``[..., agents, policies]``.
+        orders: ``[..., splits, policies]``.
+    """
+    ordered = np.take_along_axis(values[..., None, :, :], orders[..., None, :], -1)
+    cut, found = orders.shape[-1] // 2, []
+    halves = ordered[..., :cut].mean(-1), ordered[..., cut:].mean(-1)
     for chosen, measured in (halves, halves[::-1]):
-        best = np.take_along_axis(measured, chosen.argmax(1)[:, None], 1)
-        found.append([chosen.max(1, keepdims=True) - chosen, best - measured])
-    return np.concatenate(found, axis=1)
+        best = np.take_along_axis(measured, chosen.argmax(-1)[..., None], -1)
+        found.append([chosen.max(-1, keepdims=True) - chosen, best - measured])
+    return np.concatenate(found, axis=-2)
 
 
 def _regrets(halves: Sequence[Values]) -> Regrets:
     chosen, measured = np.stack(halves, axis=-1)
     worst = np.take_along_axis(measured, chosen.argmax(-1)[..., None], -1)[..., 0]
-    return Regrets(measured.mean(0), measured.mean((0, 2)), worst.mean(0))
+    return Regrets(measured.mean(-3), measured.mean((-3, -1)), worst.mean(-2))
 
 
 def intervals(cells: Sequence[Cell], splits: int = SPLITS) -> tuple[list[Interval], list[Interval]]:
@@ -141,7 +155,7 @@ def _student(value: float, variances: Values, freedoms: Values) -> Interval:
 
 
 def of_an_agent_without_regret(
-    cells: Sequence[Cell], draws: int = 200, splits: int = 10, seed: int = 0
+    cells: Sequence[Cell], draws: int = 3000, splits: int = 5, seed: int = 0
 ) -> tuple[Values, Values]:
     """Regrets that an agent would show whose true mean is the largest in each cell.
 
@@ -156,25 +170,25 @@ def of_an_agent_without_regret(
     Returns:
         Its mean and its worst regret in each repetition, both ``[draws]``.
     """
-    generator = np.random.default_rng(seed)
-    found = []
-    for draw in range(draws):
-        repeated = [_with_the_best(cell, generator) for cell in cells]
-        further = regrets(repeated, splits, seed + draw)
-        found.append([further.mean[-1], further.worst[-1]])
-    mean, worst = np.array(found).T
-    return mean, worst
+    generator, halves = np.random.default_rng(seed), []
+    for cell in cells:
+        orders = _orders(tuple(cell.policies), draws * splits, seed)
+        repeated = _with_the_best(cell, draws, generator)
+        halves.append(_below(repeated, orders.reshape(draws, splits, -1)))
+    found = _regrets(halves)
+    return found.mean[:, -1], found.worst[:, -1]
 
 
-def _with_the_best(cell: Cell, generator: np.random.Generator) -> Cell:
-    """A repetition of a cell with the further agent as its last one."""
+def _with_the_best(cell: Cell, draws: int, generator: np.random.Generator) -> Values:
+    """Repetitions with the further agent as the last one, ``[draws, agents + 1, policies]``."""
     agents, policies = cell.values.shape
     means = cell.values.mean(1, keepdims=True)
     # A mean of few policies is too close to their values.
     residuals = (cell.values - means) * np.sqrt(policies / (policies - 1))
     shared = residuals.mean(0)
     apart = (residuals - shared) * np.sqrt(agents / max(agents - 1, 1))
-    drawn = generator.integers(policies, size=policies)
-    own = apart[generator.integers(agents, size=policies), drawn]
+    drawn = generator.integers(policies, size=(draws, policies))
+    own = apart[generator.integers(agents, size=drawn.shape), drawn]
     further = means.max() + shared[drawn] + own
-    return Cell(np.vstack([means + residuals[:, drawn], further]), cell.policies, cell.place)
+    known = means + residuals[:, drawn].swapaxes(0, 1)
+    return np.concatenate([known, further[:, None]], axis=1)

@@ -491,7 +491,7 @@ def probability_of_improvement(
     `cells` holds (X's runs, Y's runs); runs on policies that only one of the two steers are left
     out. For each policy it is the Mann-Whitney statistic over all pairs of runs (Agarwal et al.
     2021), averaged over policies. The interval draws policies, or the runs of both agents where a
-    cell has one policy. Where every pair has the same winner the draws do not vary; Wilson's
+    cell has one policy. Where the policies of each cell agree the draws do not vary; Wilson's
     interval of the number of policies (or runs of the agent with fewer) takes its place. Raises
     ValueError without cells, or for a cell without a common policy.
     """
@@ -516,7 +516,7 @@ def probability_of_improvement(
             units = min(rows, columns, key=len)
         names.append(units)
     won, draws = _over_cells(drawn, names)
-    if won in (0.0, 1.0):
+    if np.ptp(draws) < 1e-9:
         number = len({name for units in names for name in units})
         return Interval(float(won), *wilson(float(won) * number, number))
     interval = percentile(float(won), draws)

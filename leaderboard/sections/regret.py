@@ -193,7 +193,9 @@ def fallback(summary: Summary, safe: Safe | None) -> str:
 
 
 def _judged(regret: Regret | None, safe: Safe) -> str:
-    if regret is None or safe.agent not in regret.learners:
+    if regret is None:
+        return "**Not tested**: there is no cell that two learners share."
+    if safe.agent not in regret.learners:
         return "**Not tested**: it is not in all of these cells."
     found = standings(regret, safe)
     texts = [

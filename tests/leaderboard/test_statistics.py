@@ -386,6 +386,10 @@ def test_probability_of_improvement_by_hand() -> None:
     runs = [(f"policy {i}", 1.0) for i in range(5)]
     never = probability_of_improvement([([(p, 0.0) for p, _ in runs], runs)] * 3)
     assert (never.value, never.low, never.high) == (0.0, *wilson(0, 5))
+    # Each of five policies agrees with the others in a cell, but cells differ.
+    ones, zeros = ([(f"{p}", value) for p in range(5)] for value in (1.0, 0.0))
+    mixed = probability_of_improvement([(ones, zeros), (ones, zeros), (zeros, ones)])
+    assert (mixed.low, mixed.high) == pytest.approx(wilson(10 / 3, 5))
     for bad in ([], [([], on("a", [1]))], [(on("a", [1]), on("b", [1]))]):
         with pytest.raises(ValueError, match=r"no cell|runs of both"):
             probability_of_improvement(bad)

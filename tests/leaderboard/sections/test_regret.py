@@ -42,6 +42,16 @@ def test_equal_agents_have_no_regret_on_average():
     assert abs(np.mean([each.worst for each in found])) < 0.01
 
 
+def test_the_halves_are_so_many_that_their_luck_does_not_show():
+    """Five policies, whose worst cells are nearly alike: other halves, the same second decimal."""
+    generator = np.random.default_rng(0)
+    cells = [cell(generator, GAPS / 2, policies=5) for _ in range(6)]
+    again = np.array([regrets(cells, seed=seed).worst for seed in range(5)])
+    assert np.ptp(again, axis=0).max() < 0.01
+    nothing = [of_an_agent_without_regret(cells, seed=seed)[1].mean() for seed in range(5)]
+    assert np.ptp(nothing) < 0.004
+
+
 def test_the_worst_cell_is_found():
     """One cell of eight, with a loss of .3 behind a scatter of .1."""
     generator = np.random.default_rng(0)
@@ -167,6 +177,10 @@ def test_a_declared_agent_is_judged_without_the_tasks_that_tested_it():
     assert "agent without regret by +0.300 of success" in without
     assert "agent without regret by +0.300 of success" in in_all
     assert [table.key.task for table in regret.compute(summary, ["A-v1"]).cells] == ["B-v1"]
+    nowhere = safe.model_copy(update={"tested_on": ("A-v1", "B-v1")})
+    assert "there is no cell that two learners share" in regret.verdict(
+        everywhere, nowhere, summary
+    )
 
 
 @pytest.mark.parametrize(
