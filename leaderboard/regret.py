@@ -107,6 +107,7 @@ def _below(values: Values, orders: NDArray[np.intp]) -> Values:
 
 
 def _regrets(halves: Sequence[Values]) -> Regrets:
+    """From `_below` of each cell; repetitions stay in front."""
     chosen, measured = np.stack(halves, axis=-1)
     worst = np.take_along_axis(measured, chosen.argmax(-1)[..., None], -1)[..., 0]
     return Regrets(measured.mean(-3), measured.mean((-3, -1)), worst.mean(-2))

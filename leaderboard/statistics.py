@@ -516,7 +516,7 @@ def probability_of_improvement(
             units = min(rows, columns, key=len)
         names.append(units)
     won, draws = _over_cells(drawn, names)
-    if np.ptp(draws) < 1e-9:
+    if np.ptp(draws) < 1e-9:  # but for rounding they are equal
         number = len({name for units in names for name in units})
         return Interval(float(won), *wilson(float(won) * number, number))
     interval = percentile(float(won), draws)

@@ -43,7 +43,7 @@ def test_equal_agents_have_no_regret_on_average():
 
 
 def test_the_halves_are_so_many_that_their_luck_does_not_show():
-    """Five policies, whose worst cells are nearly alike: other halves, the same second decimal."""
+    """Five policies, whose worst cells are nearly alike: other halves change less than .01."""
     generator = np.random.default_rng(0)
     cells = [cell(generator, GAPS / 2, policies=5) for _ in range(6)]
     again = np.array([regrets(cells, seed=seed).worst for seed in range(5)])
