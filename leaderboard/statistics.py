@@ -159,7 +159,7 @@ def _stacked_weights(seeds: tuple[int, ...], resamples: int) -> Array:
 def _weighted_sum(seeds: tuple[int, ...], values: tuple[float, ...], resamples: int) -> Array:
     # Kept, because the sections of a leaderboard draw the same samples, and most have equal counts.
     # Not `@`: matrix products would start threads for these small sums.
-    return (_stacked_weights(seeds, resamples) * np.array(values)[:, None]).sum(axis=0)
+    return np.einsum("er,e->r", _stacked_weights(seeds, resamples), np.array(values))
 
 
 def iqm(values: Sequence[float] | Array, weights: Array | None = None) -> Array:

@@ -64,8 +64,8 @@ def _by_verdict(outcomes: Sequence[ClaimOutcome]) -> str:
     """Names of claims, a line for each verdict."""
     named: dict[str, list[str]] = {}
     for outcome in outcomes:
-        rest = f" (rests on {', '.join(map(code, outcome.needs))})" if outcome.needs else ""
-        named.setdefault(outcome.verdict, []).append(title(outcome.claim) + rest)
+        name = title(outcome.claim) + _in_brackets(reservations([outcome]))
+        named.setdefault(outcome.verdict, []).append(name)
     order = ("supported", "contradicted", "equivalent", "undecided", "not tested")
     lines = [
         f"- **{verdict.capitalize()}** ({len(named[verdict])}): {'; '.join(named[verdict])}."
@@ -78,18 +78,32 @@ def _by_verdict(outcomes: Sequence[ClaimOutcome]) -> str:
 def standing(outcomes: Sequence[ClaimOutcome]) -> str:
     """The verdict of several claims: one word if they agree, else how often each was found.
 
-    And how many of them rest on a task.
+    And how many of them rest on a task, or do not hold in one.
     """
     verdicts = Counter(outcome.verdict for outcome in outcomes)
     found = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
     text = f"**{next(iter(verdicts))}**" if len(verdicts) == 1 else found
+    return text + _in_brackets(reservations(outcomes))
+
+
+def reservations(outcomes: Sequence[ClaimOutcome]) -> list[str]:
+    """How many of some claims rest on a task, and how many hold on average, but not in one."""
     resting = [outcome.needs for outcome in outcomes if outcome.needs]
-    if not resting:
-        return text
-    tasks = ", ".join(map(code, sorted({task for needs in resting for task in needs})))
-    verb = "rest" if len(resting) > 1 else "rests"
-    which = f"{len(resting)} of {len(outcomes)} {verb}" if len(outcomes) > 1 else verb
-    return f"{text} ({which} on {tasks})"
+    apart = [outcome.apart for outcome in outcomes if outcome.apart]
+    texts = []
+    for tasks, words in (
+        (resting, "rest on" if len(resting) > 1 else "rests on"),
+        (apart, "on average, but not in"),
+    ):
+        if tasks:
+            number = f"{len(tasks)} of {len(outcomes)} " if len(outcomes) > 1 else ""
+            named = sorted({task for each in tasks for task in each})
+            texts.append(f"{number}{words} {', '.join(map(code, named))}")
+    return texts
+
+
+def _in_brackets(texts: Sequence[str]) -> str:
+    return f" ({'; '.join(texts)})" if texts else ""
 
 
 def paper_page(said: dict[str, list[ClaimOutcome]], view: View) -> str:

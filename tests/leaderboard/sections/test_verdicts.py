@@ -104,6 +104,18 @@ def test_the_front_says_on_which_tasks_verdicts_rest_and_what_else_was_declared(
     assert others == "- **Not tested** (1): other."
     assert standing([rests, ClaimOutcome(other, reason="no runs")]).startswith("1 supported, 1 not")
     assert standing([rests, rests]).endswith("(2 of 2 rest on `A-v1`, `B-v1`)")
+    apart = ClaimOutcome(
+        CLAIM,
+        Normal(0.0),
+        policies=5,
+        p=0.9,
+        p_equal=0.01,
+        by_task={"C-v1": Interval(0.2, 0.1, 0.3)},
+    )
+    assert standing([apart]) == "**equivalent** (on average, but not in `C-v1`)"
+    assert standing([rests, apart]).endswith(
+        "(1 of 2 rests on `A-v1`, `B-v1`; 1 of 2 on average, but not in `C-v1`)"
+    )
 
 
 def test_the_papers_statements_have_their_tests() -> None:
